@@ -6,21 +6,10 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.accuracy_tables import FAMILIES, FEATURES, KINDS_OF_TRIALS, MAPS, SIZES, chosen
+from benchmarks.cells import percent, total
 from benchmarks.rows import CENTIMETRES, Row, read, select
-from benchmarks.tables import (
-    FAMILIES,
-    FEATURES,
-    KINDS_OF_TRIALS,
-    MAPS,
-    ONE_CORE,
-    RUN_PLACES,
-    SIZES,
-    STAGES,
-    chosen,
-    percent,
-    run_name,
-    total,
-)
+from benchmarks.speed_tables import ONE_CORE, RUN_PLACES, STAGES, run_name
 from benchmarks.trial_rows import OUTCOMES, TRIALS, label
 from benchmarks.trial_rows import read as read_trials
 from hloc_reduce.evaluation import plots

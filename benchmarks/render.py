@@ -1,19 +1,21 @@
 """Write the tables and figures of the documentation from the rows of results/ and from weights.
 
-A page has a table between the lines `<!-- table: NAME -->` and `<!-- end -->`; `benchmarks.tables`
-makes it. A figure is a file that `benchmarks.figures` draws.
+A page has a table between the lines `<!-- table: NAME -->` and `<!-- end -->`, by a function
+in `TABLES`. A figure is a file that `benchmarks.figures` draws.
 """
 
 import re
 from pathlib import Path
 
+from benchmarks import accuracy_tables, code_tables, speed_tables
+from benchmarks.cells import Table
 from benchmarks.figures import FIGURES
-from benchmarks.tables import TABLES, Table
 from hloc_reduce.evaluation import plots
 from hloc_reduce.utils import cli
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.files import replacing
 
+TABLES = accuracy_tables.TABLES | speed_tables.TABLES | code_tables.TABLES
 PAGES = (
     "README.md",
     "docs/results.md",

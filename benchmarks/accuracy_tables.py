@@ -1,6 +1,5 @@
-"""Tables of the documentation, made from the rows of results/."""
+"""Tables of the documentation about accuracy, made from the rows of results/."""
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from itertools import product
@@ -8,36 +7,15 @@ from operator import mul
 from pathlib import Path
 from statistics import mean, median
 
-from safetensors import safe_open
-
 from benchmarks import changed_photos
+from benchmarks.cells import Table, name_of, percent, thousands, total
 from benchmarks.rows import Row, read, select, with_keypoints
 from benchmarks.trial_rows import OUTCOMES, RESHAPED, STRANGERS, TRIALS
 from benchmarks.trial_rows import read as read_trials
-from hloc_reduce import projections
 from hloc_reduce.confs import features as features_confs
-from hloc_reduce.confs.features import RECOMMENDED, matcher_of
+from hloc_reduce.confs.features import matcher_of
 from hloc_reduce.detectors.dog import FAST, KEYPOINT_SETTINGS
 from hloc_reduce.evaluation import published
-from hloc_reduce.localization.exif import WELL_KNOWN
-from hloc_reduce.localization.gate import DEFAULT_GATE, FOCAL_LENGTHS, REFINED, RULES
-from hloc_reduce.mapping.adjustment import GAIN_OF_FREE, MAX_ADJUSTED_IMAGES
-from hloc_reduce.mapping.checks import (
-    contradictions,
-    copies,
-    few_points,
-    focal_lengths,
-    intrinsics,
-    lenses,
-    misfits,
-    partial,
-    positions,
-)
-from hloc_reduce.mapping.plausibility import SAME_VIEWPOINT
-from hloc_reduce.mapping.registration import MIN_VIEWPOINTS
-from hloc_reduce.networks import MINI
-from hloc_reduce.networks import WEIGHTS as NETWORKS
-from hloc_reduce.projections.files import WEIGHTS
 from hloc_reduce.utils.cli import InputError
 from hloc_reduce.utils.codes import FLOATS
 
@@ -50,7 +28,6 @@ KINDS_OF_TRIALS: dict[str, Callable[[dict], bool]] = {
     "own, wrong focal length": lambda row: row["intrinsics"] == "off",
     "not of the place": lambda row: row["kind"] in STRANGERS,
 }
-Table = list[list[str]]  # the header and the rows
 Choice = tuple[str, str]  # feature, storage
 
 FEATURES: list[Choice] = [
@@ -122,7 +99,6 @@ LIGHTGLUE_PLACES = (
     *("herz-jesus", "dark-fountain-P11", "dark-sceaux"),
     *(f"sparse-{place}" for place in ("herz-jesus", "fountain-P11", "sceaux")),
 )
-MANY_IMAGES = 1_000_000  # from which the table of retrieval has them
 # from what `benchmarks.changed_photos` changes to what tables say
 CHANGED_PHOTOS = {
     "map 1, queries 1, turned 0": "unchanged",
@@ -133,30 +109,9 @@ CHANGED_PHOTOS = {
     "map 1, queries 1, middle 0.5, turned 0": "their middle, half of each side",
     "map 1, queries 1, turned 90": "turned by 90°",
 }
-SECONDS_OF_PAIRS = {
-    "early exit, 1 thread": "one core",
-    "early exit, 2 pairs at a time": "a pair on each of two cores",
-}
-ONE_CORE = "1 core"
-OLDEST = "pycolmap 3.13"
-RUN_PLACES = "herz-jesus", "day-fountain-P11"
-# of the rows of runs, in the table
-SHOWN_RUNS = "", with_keypoints(KEYPOINT_SETTINGS[0])
-FAST_RUN = f"`{RECOMMENDED}`, `{FAST}` keypoints"
-STAGES = ("extraction", "matching", "triangulation", "localization")
 PAPER = ("sift", "mkd", "tfeat")
 PAPER_DIMS = (64, 32, 24, 16)
 SCHEMES = ("sv", "ss", "us", "pca")
-
-
-def percent(rows: list[Row], measure: str) -> float:
-    """Return the share of all queries that a measure counts, in percent."""
-    return 100 * total(rows, measure) / total(rows, "queries")
-
-
-def total(rows: list[Row], measure: str) -> float:
-    """Return the sum of a measure."""
-    return sum(float(row[measure]) for row in rows)
 
 
 def inliers(rows: list[Row], place: str, part: str) -> str:
@@ -384,20 +339,6 @@ def inliers_and_median(row: Row) -> str:
     return f"{float(row['inliers']):,.0f}{median}"
 
 
-def lightglue_seconds_table() -> Table:
-    """Show the time and the matches of a pair with LightGlue, by keypoints."""
-    table = [["feature", "keypoints", *(f"{head} [ms]" for head in SECONDS_OF_PAIRS.values())]]
-    rows = read("lightglue_seconds")
-    for feature in dict.fromkeys(row["feature"] for row in rows):
-        of_feature = select(rows, feature=feature)
-        by_number = {int(row["list"].split()[0]): row["list"] for row in of_feature}
-        for number, name in sorted(by_number.items())[1:]:
-            found = {row["variant"]: row for row in select(of_feature, list=name)}
-            cells = [f"{float(found[variant]['ms']):,.0f}" for variant in SECONDS_OF_PAIRS]
-            table.append([f"`{feature}`", f"{number:,}", *cells])
-    return table
-
-
 def changed_photos_table() -> Table:
     """Show what networks localize of changed queries, and in a map of small photos."""
     rows = read("changed_photos")
@@ -434,34 +375,6 @@ def rigs_table() -> Table:
     return table
 
 
-def localizer_table() -> Table:
-    """Show what a Localizer takes, from the start of Python to poses."""
-    stages = {"extraction": "extraction", "retrieval": "retrieval", "matching": "matching"}
-    stages |= {"pose": "pose", "mirror_image": "mirror image", "all": "all"}
-    heads = "intrinsics, cores", "map open [s]", "first pose [s]", "memory [MB]"
-    table = [["feature", *heads, *(f"{said} [ms]" for said in stages.values())]]
-    for row in read("localizer"):
-        cells = [name_of(row), row["variant"].replace(" intrinsics", "")]
-        cells += [f"{float(row['open_s']):.1f}", f"{float(row['first_s']):.1f}"]
-        cells += [thousands(row["resident_mb"])]
-        table.append([*cells, *(f"{float(row[f'{stage}_ms']):.0f}" for stage in stages)])
-    return table
-
-
-def tracking_table() -> Table:
-    """Compare frames of a video that are tracked with frames that are localized anew."""
-    heads = "localized", "within 5 cm", "median [cm]", "by the last pose [%]"
-    table = [["feature", "frames", *heads, "beyond extraction [ms]"]]
-    for row in read("tracking"):
-        if not row["variant"].startswith(("anew, ", "tracked, ")):
-            continue  # that nothing is wrong there is said in words
-        cells = [name_of(row), row["variant"], f"{row['localized']} of {row['queries']}"]
-        cells += [row["within_5cm"], f"{float(row['median_cm']):.2f}"]
-        cells += [f"{float(row['near_percent']):.0f}", f"{float(row['ms']):.0f}"]
-        table.append(cells)
-    return table
-
-
 def own_maps_table() -> Table:
     """Compare maps of photos alone, and queries in them, of places with known poses."""
     heads = "photos in the maps", "localized", "far", "median [%]", "inliers"
@@ -488,20 +401,6 @@ def own_maps_table() -> Table:
     return table
 
 
-def retrieval_table() -> Table:
-    """Show how long the search for similar images takes, by their number."""
-    table = [["images", "search", "a query [ms]", "index [s]", "right of the first 20"]]
-    rows = [row for row in read("retrieval") if int(row["photos"]) >= MANY_IMAGES]
-    for row in sorted(rows, key=lambda row: int(row["photos"])):
-        measures = (
-            f"{float(row['ms']):.3g}",
-            f"{float(row['build_s']):.1f}",
-            f"{float(row['right']):.1f}",
-        )
-        table.append([thousands(row["photos"]), row["variant"], *measures])
-    return table
-
-
 def accuracy(rows: list[Row]) -> str:
     """Format the queries within 1 and 5 cm, and the mean inliers, of query lists."""
     near = (f"{total(rows, f'within_{limit}cm'):.0f}" for limit in (1, 5))
@@ -511,268 +410,7 @@ def accuracy(rows: list[Row]) -> str:
     return f"{' / '.join(near)} of {sum(queries):.0f}; {mean:,.0f}"
 
 
-def runs_table() -> Table:
-    """Compare whole runs with hloc's, stage by stage."""
-    table = [["seconds", *STAGES, "all", "hloc / this", "fountain-P11", "features [MB]"]]
-    table[0] += ["matches [MB]"]
-    runs, others = (select(read("runs"), place=place) for place in RUN_PLACES)
-    for row in sorted(runs, key=lambda row: -float(row["seconds"])):
-        if row["variant"] not in SHOWN_RUNS and run_name(row) != FAST_RUN:
-            continue
-        [other] = select(others, **{key: row[key] for key in ("feature", "storage", "variant")})
-        cells = [f"{float(row[f'{stage}_s']):.1f}" for stage in STAGES]
-        cells += [f"{float(row['seconds']):.1f}"]
-        for of_place, one in ((runs, row), (others, other)):
-            [reference] = select(of_place, feature="hloc")
-            cells += [f"{float(reference['seconds']) / float(one['seconds']):.1f}"]
-        cells += [f"{float(row['feature_mb']):.1f}", f"{float(row['match_mb']):.2f}"]
-        table.append([run_name(row), *cells])
-    return table
-
-
-def run_name(row: Row) -> str:
-    """Name the feature of a run, and its keypoints unless they are found as by default."""
-    keypoints = row["variant"].removesuffix(" keypoints")
-    usual = keypoints in ("", KEYPOINT_SETTINGS[0])
-    return name_of(row) + ("" if usual else f", `{keypoints}` keypoints")
-
-
-def name_of(row: Row) -> str:
-    """Name a feature and, unless it is float16, the storage of its map."""
-    storage = row["storage"]
-    return f"`{row['feature']}`" + (f", `{storage}`" if storage not in ("", FLOATS[0]) else "")
-
-
-def runs_cpu_table() -> Table:
-    """Show the CPU seconds of whole runs, and those that no run of the same photos is without."""
-    table = [["CPU seconds", *STAGES, "all", "of one pass of the detector", "of the products"]]
-    runs = select(read("runs"), place=RUN_PLACES[0])
-    usual = "", with_keypoints(KEYPOINT_SETTINGS[0])
-    runs = [row for row in runs if row["variant"] in usual]
-    for row in sorted(runs, key=lambda row: -cpu_of(row)):
-        cells = [f"{float(row[f'{stage}_cpu_s']):.1f}" for stage in STAGES]
-        limits = [row["extraction_limit_s"], row["matching_limit_s"]]
-        cells += [f"{cpu_of(row):.1f}", *(f"{float(one):.1f}" if one else "" for one in limits)]
-        table.append([run_name(row), *cells])
-    return table
-
-
-def cpu_of(row: Row) -> float:
-    """Return the CPU seconds of a whole run."""
-    return sum(float(row[f"{stage}_cpu_s"]) for stage in STAGES)
-
-
-def extraction_table() -> Table:
-    """Show how long features of a photo take on a core of a CPU."""
-    table = [["feature", "keypoints", "CPU [s]"]]
-    for row in select(read("extraction"), variant=ONE_CORE):
-        seconds = f"{float(row['cpu_s']):.2f}"
-        table.append([f"`{row['feature']}`", thousands(row["keypoints"]), seconds])
-    return table
-
-
-def scale_table() -> Table:
-    """Show what all pairs of Aachen Day-Night cost, extrapolated."""
-    rows = select(read("scale"), list="whole", variant="8000 keypoints")
-    rows.sort(key=lambda row: -float(row["feature_mb"]))
-    heads = [f"{row['feature']}, `{row['storage']}`" for row in rows]
-    [triangulated] = select(read("scale"), list="whole", variant="triangulation")
-    minutes = float(triangulated["triangulation_cpu_s"]) / 60
-    gigabytes = float(triangulated["peak_mib"]) * 2**20 / 1e9
-    return [
-        ["", *heads],
-        ["feature file [MB]", *(thousands(row["feature_mb"]) for row in rows)],
-        ["match file [MB]", *(thousands(row["match_mb"]) for row in rows)],
-        ["matching [minutes]", *(f"{float(row['matching_s']) / 60:.0f}" for row in rows)],
-        ["triangulation, one core [minutes]", *(f"{minutes:.0f}" for _ in rows)],
-        ["memory of the triangulation [GB]", *(f"{gigabytes:.1f}" for _ in rows)],
-    ]
-
-
-def ransacs_table() -> Table:
-    """Show how long RANSACs take and what they localize, by the share of right matches."""
-    rows = [row for row in read("ransacs") if not row["variant"].startswith(OLDEST)]
-    parts = sorted({row["list"] for row in rows}, key=lambda part: int(part.split()[0]))
-    table = [["CPU [ms], queries within 5 cm"]]
-    for part in parts:
-        queries = select(rows, list=part)[0]["queries"]
-        table[0].append(f"{part} ({queries})")
-    for variant in dict.fromkeys(row["variant"] for row in rows):
-        of_variant = [select(rows, list=part, variant=variant) for part in parts]
-        cells = [f"{float(row['ms']):.3g}, {row['within_5cm']}" for [row] in of_variant]
-        table.append([variant, *cells])
-    return table
-
-
-def adding_table() -> Table:
-    """Show what adding photos to a map costs, and building maps of the same photos."""
-    variants = {"at once": "all at once", "others": "the others", "alone": "the 20 alone"}
-    variants |= {"added": "the 20 added"}
-    errors = ["median error, all at once [%]", "20 added [%]"]
-    table = [["photos", *(f"{text} [s]" for text in variants.values()), *errors]]
-    rows = read("adding")
-    for place, part in dict.fromkeys((row["place"], row["list"]) for row in rows):
-        found = {row["variant"]: row for row in select(rows, place=place, list=part)}
-        cells = [f"{float(found[key]['cpu_s']):.0f}" for key in variants]
-        cells += [f"{float(found[key]['median_percent']):.2g}" for key in ("at once", "added")]
-        table.append([f"`{place}`, {part.split()[0]}", *cells])
-    return table
-
-
-def compact_scale_table() -> Table:
-    """Show what compact maps of parts and of multiples of Aachen's size cost."""
-    columns = {"mb": "file [MB]", "build_cpu_s": "build [s]", "build_mb": "build [MB]"}
-    columns |= {"open_cpu_s": "open [s]", "resident_mb": "resident [MB]"}
-    columns |= {"first_query_file_mb": "first query, touched [MB]"}
-    columns |= {"query_file_mb": "a query, touched [MB]", "query_cpu_s": "a query [s]"}
-    table = [["images", "points", *columns.values(), "localized"]]
-    for row in sorted(read("compact_scale"), key=lambda row: float(row["mb"])):
-        cells = [f"{float(f'{float(row[key]):.3g}'):,}".removesuffix(".0") for key in columns]
-        counts = thousands(row["photos"]), thousands(row["points"])
-        table.append([*counts, *cells, f"{row['localized']} of {row['queries']}"])
-    return table
-
-
-def matching_table() -> Table:
-    """Show how long a pair of images takes to match, by dimensions and storage."""
-    rows, storages = read("matching"), ("float32", "uint4")
-    table = [["numbers", "hloc", "torch, floats", *(f"`{storage}`" for storage in storages)]]
-    for dim in (128, 64, 32, 24, 16):
-        found = select(rows, feature=f"{dim} numbers")
-        cells = select(found, variant="hloc") or select(found, variant="torch")
-        cells += select(found, variant="ours, run")
-        for storage in storages:
-            by_integers = select(found, storage=storage, commit=cells[0]["commit"])
-            cells += [row for row in by_integers if row["variant"].startswith(f"{storage} by ")]
-        if len(cells) != 2 + len(storages):
-            raise InputError(f"results/matching.csv lacks rows of {dim} numbers.")
-        table.append([str(dim), *(f"{float(row['ms']):.0f}" for row in cells)])
-    return table
-
-
-def thousands(number: str) -> str:
-    """Format a number with commas."""
-    return f"{float(number):,.0f}"
-
-
-def limits_table() -> Table:
-    """List what a pose must have to be localized."""
-    rows = [pair for rule in RULES for pair in ((rule.text, rule.limit), *rule.parts)]
-    return [["a pose must", "limit"], *map(list, rows)]
-
-
-def map_limits_table() -> Table:
-    """List what is judged of a map."""
-    low, high = FOCAL_LENGTHS
-    tolerance = contradictions.ELSEWHERE
-    few, share = few_points.HINGE_POINTS, few_points.HINGE_SHARE
-    spread = focal_lengths.SPREAD
-    return [
-        ["what is judged", "limit"],
-        [
-            "viewpoints of a model",
-            f"at least {MIN_VIEWPOINTS}; photos nearer than {100 * SAME_VIEWPOINT:g} % of the "
-            "distance to the scene are one",
-        ],
-        [
-            "focal length of a photo",
-            f"{low:g} to {high:g} longer sides; within a factor of {REFINED:g} of its EXIF data, "
-            f"unless {WELL_KNOWN} photos share the camera",
-        ],
-        ["distortion of a photo", f"at most {lenses.MAX_DISTORTION:g}"],
-        [
-            "shared points of a photo",
-            f"at least {DEFAULT_GATE.min_inliers}; {few}, where most photos have more than "
-            f"{1 / share:g} times as many",
-        ],
-        [
-            "share of the predicted points that two groups share",
-            f"{100 * copies.JOINED_SHARE:g} %, or {100 * copies.APART_SHARE:g} % for groups that "
-            "the mapper did not connect directly",
-        ],
-        [
-            "ratio of estimated focal lengths of photos of one size",
-            f"a warning above {focal_lengths.SPREAD_OF_FEW:g}, refused above {spread:g}",
-        ],
-        [
-            "photo placed elsewhere by the points of others",
-            f"{100 * tolerance.position:g} % of the distance or {tolerance.rotation:g}°, while "
-            "less than half of its matches agree",
-        ],
-        [
-            "matches of a photo off their epipolar lines",
-            f"half of them by more than {misfits.MISFIT_PIXELS:g} pixel, and "
-            f"{misfits.MISFIT_RATIO:g} times as far as is typical: refused",
-        ],
-        [
-            "uncertain position of a photo",
-            f"a warning above {100 * positions.MAX_DEVIATION:g} % of the distance; refused if "
-            f"{100 * positions.MANY_UNCERTAIN_SHARE:g} % of the photos are above",
-        ],
-        [
-            f"fall of the reprojection error with free principal points (up to "
-            f"{MAX_ADJUSTED_IMAGES} photos)",
-            f"photos are left out, or a warning, above {100 * GAIN_OF_FREE:g} %; "
-            f"{100 * intrinsics.GAIN_OF_OWN:g} % if photos share cameras",
-        ],
-        [
-            "photos in the map",
-            f"a warning below {100 * partial.ENOUGH_REGISTERED:g} %, refused below half",
-        ],
-    ]
-
-
-def projections_table() -> Table:
-    """List the projections that ship, by what they project, from their metadata."""
-    by_base: dict[str, list[tuple[dict, int]]] = {}
-    for name in projections.names():
-        metadata = projections.load(name).metadata
-        size = (WEIGHTS / f"{name}.safetensors").stat().st_size
-        by_base.setdefault(metadata["descriptor"], []).append((metadata, size))
-    rows = [["of", "schemes", "KB", "layers", "places", "observations"]]
-    for base, files in by_base.items():
-        schemes = sorted({f"`{metadata['scheme']}`" for metadata, _ in files})
-        layers = max((metadata["layers"] for metadata, _ in files), key=len)
-        data = files[0][0]["training_data"]
-        assert all(metadata["training_data"].keys() == data.keys() for metadata, _ in files)
-        rows.append(
-            [
-                f"`{base}`",
-                ", ".join(schemes),
-                f"{sum(size for _, size in files) / 1e3:,.0f}",
-                "-".join([*map(str, layers[:-1]), "D"]),
-                str(len(data)),
-                f"{sum(place['observations'] for place in data.values()):,}",
-            ]
-        )
-    return rows
-
-
-def networks_table() -> Table:
-    """List the networks that ship, from their metadata."""
-    rows = [["file", "KB", "what", "photos", "steps"]]
-    for name in (*MINI, *(f"lightglue/{mini}" for mini in MINI)):
-        path = NETWORKS / f"{name}.safetensors"
-        with safe_open(path, "np") as file:
-            metadata = file.metadata()
-        told = json.loads(metadata.get("metadata") or metadata["training"])
-        is_mini = "architecture" in told
-        what = f"{told['architecture']}; teacher {told['teacher']}" if is_mini else "LighterGlue"
-        photos = told["photos"] if is_mini else sum(told["maps"].values())
-        rows.append(
-            [
-                f"`{name}`",
-                f"{path.stat().st_size / 1e3:,.0f}",
-                what,
-                *(str(number) for number in (photos, told["steps"])),
-            ]
-        )
-    return rows
-
-
 TABLES: dict[str, Callable[[], Table]] = {
-    "projections": projections_table,
-    "networks": networks_table,
     "features": features_table,
     "readme": readme_table,
     "keypoints": keypoints_table,
@@ -782,23 +420,9 @@ TABLES: dict[str, Callable[[], Table]] = {
     "small_maps": small_maps_table,
     "map_parts": map_parts_table,
     "false_accepts": false_accepts_table,
-    "limits": limits_table,
-    "map_limits": map_limits_table,
     "lightglue": lightglue_table,
     "lightglue_bytes": lightglue_bytes_table,
-    "lightglue_seconds": lightglue_seconds_table,
-    "retrieval": retrieval_table,
     "changed_photos": changed_photos_table,
     "rigs": rigs_table,
-    "runs": runs_table,
-    "runs_cpu": runs_cpu_table,
-    "extraction": extraction_table,
-    "localizer": localizer_table,
     "own_maps": own_maps_table,
-    "tracking": tracking_table,
-    "adding": adding_table,
-    "ransacs": ransacs_table,
-    "scale": scale_table,
-    "compact_scale": compact_scale_table,
-    "matching": matching_table,
 }
