@@ -19,6 +19,7 @@ import yaml
 
 from benchmarks import (
     accuracy,
+    accuracy_tables,
     adding,
     against_hloc,
     changed_photos,
@@ -30,7 +31,6 @@ from benchmarks import (
     rows,
     selections,
     split_place,
-    tables,
     trial_rows,
     triangulation_scale,
     video,
@@ -369,7 +369,7 @@ def test_how_often_the_gate_errs_in_the_trials(trials):
     def share(rows):
         return sum(row["accepted"] for row in rows) / len(rows)
 
-    own = [row for row in trials if row["kind"] in tables.OWN and row["outcome"] == "true"]
+    own = [row for row in trials if row["kind"] in accuracy_tables.OWN and row["outcome"] == "true"]
     assert 1 - share(own) <= 0.016
     wrong = [row for row in trials if row["outcome"] == "wrong"]
     assert share([row for row in wrong if row["kind"] in trial_rows.STRANGERS]) == 0
@@ -382,7 +382,7 @@ def test_no_pose_of_another_place_is_certain_and_most_right_ones_are(trials):
     kinds = "other", "turned"
     elsewhere = [row["measures"].confidence for row in poses if row["kind"] in kinds]
     assert len(elsewhere) > 1500 and 1.5 * max(elsewhere) < absolute_pose.CERTAIN
-    own = [row for row in poses if row["kind"] in tables.OWN and row["outcome"] == "true"]
+    own = [row for row in poses if row["kind"] in accuracy_tables.OWN and row["outcome"] == "true"]
     certain = [row["measures"].confidence >= absolute_pose.CERTAIN for row in own]
     assert np.mean(certain) > 0.94  # with dark and blurred ones
 
