@@ -269,8 +269,10 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
     is_better = (its_errors**2).sum() <= (errors**2).sum()
     if not (is_better or abs(np.log(ratio)) <= max(FOCAL_DEVIATIONS * deviation, FOCAL_SHARE)):
         return pose
+    precision = pose.measures.uncertainty.at_least(*(typical.precision or UNDETERMINED)[:2])
+    measures = replace(pose.measures, uncertainty=precision)
     number, value = typical.num_inliers, typical.confidence
-    return replace(typical, measures=replace(pose.measures, num_inliers=number, confidence=value))
+    return replace(typical, measures=replace(measures, num_inliers=number, confidence=value))
 
 
 def _of_outliers(matches: Matches, pose: Pose) -> list[Pose]:

@@ -1,5 +1,6 @@
 """Queries without intrinsics, of the size of the map's photos: perhaps by their lens."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -112,6 +113,22 @@ def test_the_typical_lens_does_not_make_up_for_a_flat_scene():
 def test_a_pose_with_the_typical_lens_is_judged():
     found, _ = solve(LENS, 30, 0.2, gate=Gate(min_inliers=31, min_probability=0))
     assert found.refusal == "too few inliers: 30, at least 31 are needed"
+
+
+def test_a_pose_with_the_typical_lens_is_no_more_certain_than_its_matches_make_it(monkeypatch):
+    """It may be bent by a match although the pose with an estimated lens is not."""
+    agreed = absolute_pose._agreed
+
+    def moved(matches, pose):
+        found = agreed(matches, pose)
+        if not matches.is_lens_by_size:
+            return found
+        return replace(found, precision=found.precision.at_least(0.05, 0))
+
+    monkeypatch.setattr(absolute_pose, "_agreed", moved)
+    found, _ = solve.__wrapped__(LENS, 30, 0.2)
+    assert found.camera.params.tolist() == [900, 640, 480, -0.05]
+    assert "its position is uncertain by 5.0 %" in found.refusal
 
 
 @pytest.mark.parametrize("lean", [0.065, 0.08])
