@@ -226,10 +226,7 @@ def _measures(
         return measures
     view = pose.cam_from_world, pose.camera
     uncropped = uncertainty(*matches.inliers(pose), *view, ALL)
-    precision = pose.precision
-    if precision is None:
-        precision = _precision(matches, pose, _all_but_most_telling(matches, pose))
-    return replace(measures, uncertainty=precision, uncropped=uncropped)
+    return replace(measures, uncertainty=_precision_of(matches, pose), uncropped=uncropped)
 
 
 def _off_centre(camera: pycolmap.Camera, x: float, y: float) -> float:
@@ -241,7 +238,8 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
     """Estimate a measured pose anew with the lens of the map's photos, if that fits.
 
     All photos of a map determine their lens better than the matches of one more photo do. But that
-    this lens has taken the photo is likely, not certain: the new pose counts as no more precise.
+    this lens has taken the photo is likely, not certain: the new pose counts as no more precise
+    than the old one.
 
     Returns:
         The new pose, or the old one if the lens is not known or does not fit. If all intrinsics
@@ -269,7 +267,7 @@ def _with_typical_lens(matches: Matches, pose: Pose) -> Pose:
     is_better = (its_errors**2).sum() <= (errors**2).sum()
     if not (is_better or abs(np.log(ratio)) <= max(FOCAL_DEVIATIONS * deviation, FOCAL_SHARE)):
         return pose
-    precision = pose.measures.uncertainty.at_least(*(typical.precision or UNDETERMINED)[:2])
+    precision = pose.measures.uncertainty.at_least(*_precision_of(known, typical)[:2])
     measures = replace(pose.measures, uncertainty=precision)
     number, value = typical.num_inliers, typical.confidence
     return replace(typical, measures=replace(measures, num_inliers=number, confidence=value))
@@ -370,9 +368,10 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
     """
     before: Pose | None = None
     for _ in range(REESTIMATIONS):
-        which = _all_but_most_telling(matches, pose)
-        if which is None or (others := _refined_by(matches, pose, which)) is None:
+        if (kept := _all_but_most_telling(matches, pose)) is None:
             return pose
+        if (others := _refined_by(matches, pose, kept)) is None:
+            break
         assert others.cam_from_world is not None
         agree = others.inliers & pose.inliers
         given = matches.points2D[agree], matches.points3D[agree]
@@ -381,10 +380,10 @@ def _agreed(matches: Matches, pose: Pose) -> Pose:
         is_near = expected.allows(*apart(pose, others, matches.points3D))
         # nothing is left out if few of the others agree among themselves
         if is_near or not 2 * others.num_inliers > pose.num_inliers:
-            return replace(pose, precision=_precision(matches, pose, which, others))
+            return replace(pose, precision=_precision(matches, pose, kept, others))
         before, pose = pose, _judged(matches, others)
-    which = _all_but_most_telling(matches, pose)
-    return replace(pose, precision=_precision(matches, pose, which, before))
+    kept = _all_but_most_telling(matches, pose)
+    return replace(pose, precision=_precision(matches, pose, kept, before))
 
 
 def _all_but_most_telling(matches: Matches, pose: Pose) -> np.ndarray | None:
@@ -395,35 +394,42 @@ def _all_but_most_telling(matches: Matches, pose: Pose) -> np.ndarray | None:
     """
     if pose.cam_from_world is None:
         return None
-    others = all_but_most_telling(_seen(matches, pose), pose.degrees_of_freedom)
-    if others is None:
+    inliers = all_but_most_telling(_seen(matches, pose), pose.degrees_of_freedom)
+    if inliers is None:
         return None
-    which = pose.inliers.copy()
-    which[which] = others
-    return which
+    kept = pose.inliers.copy()
+    kept[kept] = inliers
+    return kept
 
 
 def _precision(
-    matches: Matches, pose: Pose, which: np.ndarray | None, others: Pose | None = None
+    matches: Matches, pose: Pose, kept: np.ndarray | None, other: Pose | None = None
 ) -> Uncertainty:
     """Return how precisely the inliers of a pose fix it, even without those that tell most.
 
-    That is the `uncertainty_without_one`, or how far the pose moves without them if that is more
-    and its focal length is known: an estimated one makes up for motions along the optical axis.
+    If the focal length is known, the pose is at least as uncertain as it is apart from another one:
+    an estimated focal length makes up for motions along the optical axis.
 
     Args:
         matches: of the query.
         pose: the pose.
-        which: `_all_but_most_telling`.
-        others: the pose that these give, None if it is not known.
+        kept: `_all_but_most_telling`.
+        other: the pose by these, or before others were left out; None if there is none.
     """
-    if which is None:
+    if kept is None:
         return UNDETERMINED
     seen, freedom = _seen(matches, pose), pose.degrees_of_freedom
-    found = uncertainty_without_one(seen, freedom, which[pose.inliers])
-    if freedom > POSE or others is None:
+    found = uncertainty_without_one(seen, freedom, kept[pose.inliers])
+    if freedom > POSE or other is None:
         return found
-    return found.at_least(*apart(pose, others, matches.points3D))
+    return found.at_least(*apart(pose, other, matches.points3D))
+
+
+def _precision_of(matches: Matches, pose: Pose) -> Uncertainty:
+    """Return the `_precision` of a pose, which may be known."""
+    if pose.precision is not None:
+        return pose.precision
+    return _precision(matches, pose, _all_but_most_telling(matches, pose))
 
 
 def _seen(matches: Matches, pose: Pose) -> Seen:

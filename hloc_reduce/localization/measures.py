@@ -21,7 +21,7 @@ LEAST_NOISE = 0.5  # pixels, the least standard deviation of a keypoint
 INDEPENDENT = 100  # inliers with independent errors: neighbors err alike
 # the same where other intrinsics may make up for errors of the map, which are alike in a bent one
 INDEPENDENT_IF_BENT = 30
-DEVIATIONS = 3.0  # of a pose by all other matches, from which on one contradicts them
+DEVIATIONS = 3.0  # standard deviations by which a pose may be off
 MIN_MATCHES = 6  # of an image whose matches may tell whether a pose is right
 
 
@@ -175,12 +175,17 @@ class Uncertainty(NamedTuple):
     focal_length: float
 
     def allows(self, position: float, rotation: float) -> bool:
-        """Return whether a pose that is so uncertain may be so far from the right one."""
+        """Tell whether a pose that is so uncertain may be off by so much.
+
+        Args:
+            position: in units of the inliers' median depth.
+            rotation: in degrees.
+        """
         near = position <= DEVIATIONS * self.position
         return bool(near and rotation <= DEVIATIONS * self.rotation)
 
     def at_least(self, position: float, rotation: float) -> "Uncertainty":
-        """Return it, but no less than what a pose is known to be off by."""
+        """Return it, but with at least this for the position and the rotation, see `allows`."""
         return self._replace(
             position=max(self.position, position), rotation=max(self.rotation, rotation)
         )
@@ -383,18 +388,18 @@ def all_but_most_telling(seen: Seen, degrees_of_freedom: int = POSE) -> np.ndarr
 
 
 def uncertainty_without_one(
-    seen: Seen, degrees_of_freedom: int = POSE, others: np.ndarray | None = None
+    seen: Seen, degrees_of_freedom: int = POSE, kept: np.ndarray | None = None
 ) -> Uncertainty:
-    """Estimate the `uncertainty` of a pose by its inliers, `all_but_most_telling`.
+    """Estimate the `uncertainty` of a pose by all inliers but those that tell most about it.
 
     Args:
         seen: the inliers.
         degrees_of_freedom: the number of unknown parameters, see `projection`.
-        others: (M,) bool, `all_but_most_telling` if they are known.
+        kept: (M,) bool, `all_but_most_telling` if they are known.
     """
-    if others is None and (others := all_but_most_telling(seen, degrees_of_freedom)) is None:
+    if kept is None and (kept := all_but_most_telling(seen, degrees_of_freedom)) is None:
         return UNDETERMINED
-    left = seen._replace(points2D=seen.points2D[others], points3D=seen.points3D[others])
+    left = seen._replace(points2D=seen.points2D[kept], points3D=seen.points3D[kept])
     return uncertainty(*left[:4], degrees_of_freedom, independent_of([left]))
 
 
@@ -447,7 +452,8 @@ class Measures:
         confidence: see `confidence`; minus infinity without a pose.
         agreement: see `agreement`.
         uncertainty: see `uncertainty_without_one`, with the degrees of freedom of the estimation;
-            if the focal length is known, at least how far the pose moves without it.
+            if the focal length is known, at least how far the pose moves without the place that
+            tells most.
         uncropped: see `uncertainty`, with all intrinsics unknown, as those of a photo that was
             cropped.
         degrees_of_freedom: of the estimation, see `projection`.

@@ -304,23 +304,24 @@ def _with_inliers(sights: Sequence[Sight], pose: pycolmap.Rigid3d) -> RigPose:
 def _agreed(sights: Sequence[Sight], found: RigPose) -> RigPose:
     """Leave out the place that tells most about a pose, as long as it contradicts all others.
 
-    As `absolute_pose.estimate` does with that of a photo. How precisely the others fix the pose is
-    its uncertainty, or how far it moves without that place if that is more.
+    As `absolute_pose.estimate` does with that of a photo. The pose that is returned has its
+    uncertainty, unless the inliers do not determine it.
     """
     before: RigPose | None = None
     for _ in range(absolute_pose.REESTIMATIONS):
-        left = _all_but_most_telling(sights, found)
-        if left is None or (others := _refined_by(sights, found, left)) is None:
+        if (kept := _all_but_most_telling(sights, found)) is None:
             return found
+        if (others := _refined_by(sights, found, kept)) is None:
+            break
         agree = [a & b for a, b in zip(others.inliers, found.inliers, strict=True)]
         expected = _uncertainty(sights, others, agree, INDEPENDENT)
         is_near = expected.allows(*_apart(sights, found, others))
         if is_near or not 2 * others.measures.num_inliers > found.measures.num_inliers:
-            return _with_uncertainty(sights, found, left, others)
+            return _with_uncertainty(sights, found, kept, others)
         assert others.rig_from_world is not None
         before, found = found, _judged(sights, others.rig_from_world)
-    left = _all_but_most_telling(sights, found)
-    return found if left is None else _with_uncertainty(sights, found, left, before)
+    kept = _all_but_most_telling(sights, found)
+    return found if kept is None else _with_uncertainty(sights, found, kept, before)
 
 
 def _all_but_most_telling(sights: Sequence[Sight], found: RigPose) -> list[np.ndarray] | None:
@@ -335,9 +336,9 @@ def _all_but_most_telling(sights: Sequence[Sight], found: RigPose) -> list[np.nd
     if rig_covariance(agreeing, cams_from_rig) is None:
         return None
     camera, telling = most_telling(agreeing, cams_from_rig)
-    left = [inliers.copy() for inliers in found.inliers]
-    left[camera][found.inliers[camera]] = ~telling
-    return left
+    kept = [inliers.copy() for inliers in found.inliers]
+    kept[camera][found.inliers[camera]] = ~telling
+    return kept
 
 
 def _refined_by(
@@ -391,19 +392,19 @@ def _uncertainty(
 
 
 def _with_uncertainty(
-    sights: Sequence[Sight], found: RigPose, left: list[np.ndarray], others: RigPose | None
+    sights: Sequence[Sight], found: RigPose, kept: list[np.ndarray], other: RigPose | None
 ) -> RigPose:
-    """Return a pose with its uncertainty.
+    """Return a pose with its uncertainty, at least as large as it is apart from another one.
 
     Args:
         sights: what each camera sees.
         found: the pose.
-        left: of each camera the inliers (M,) bool, `_all_but_most_telling`.
-        others: the pose that these give, None if it is not known.
+        kept: of each camera the inliers (M,) bool, `_all_but_most_telling`.
+        other: the pose by these, or before others were left out; None if there is none.
     """
-    value = _uncertainty(sights, found, left)
-    if others is not None:
-        value = value.at_least(*_apart(sights, found, others))
+    value = _uncertainty(sights, found, kept)
+    if other is not None:
+        value = value.at_least(*_apart(sights, found, other))
     return replace(found, measures=replace(found.measures, uncertainty=value))
 
 
@@ -417,7 +418,7 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
     Args:
         sights: what each camera sees.
         best: the pose.
-        found: all poses, that one included.
+        found: all poses, of which some may be the same.
     """
     assert best.rig_from_world is not None
     agreeing = _chosen(sights, best.rig_from_world, best.inliers)
@@ -427,7 +428,7 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
     for one in sights:
         images += [start + chosen for chosen in one.images]
         start += len(one.points2D)
-    others = [one for one in found if one is not best and _shares_few(best, one)]
+    others = [one for one in found if _shares_few(best, one)]
     rivals = [rival for one in others if (rival := _rival(best, one, depth))]
     measures = replace(
         best.measures,

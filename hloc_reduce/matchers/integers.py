@@ -1,16 +1,20 @@
 """Mutual nearest neighbours of descriptors that are rounded to integers."""
 
-from functools import partial
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
 from ..runtime import parallel
+from ..runtime.trace import span
 from ..utils import best_two
 from ..utils.arrays import distinct
 from ..utils.codes import INTEGER_SCALE
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 TILE_PRODUCTS = 2**19  # at once
-DESCRIPTORS_PER_BLOCK = 2048  # that a thread matches at once
+PRODUCTS_PER_TASK = 2**23  # of a thread; fewer take less time than threads do to start
 
 
 def is_worthwhile(coded: bool) -> bool:
@@ -198,10 +202,8 @@ def match_images_of_points(
     """
     limits = ratio_threshold, distance_threshold
     forward, cosine = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
-    blocks = [
-        slice(start, start + DESCRIPTORS_PER_BLOCK)
-        for start in range(0, len(points), DESCRIPTORS_PER_BLOCK)
-    ]
+    size = max(1, PRODUCTS_PER_TASK // max(1, len(query)))
+    blocks = [slice(start, start + size) for start in range(0, len(points), size)]
 
     def search(block: slice) -> None:
         forward[block], cosine[block] = nearest(points[block], query, *limits)
@@ -218,10 +220,14 @@ def match_images_of_points(
         matched = matches >= 0
         return most_similar_first(matches[matched], own[matched], similar[matched])
 
-    # one block takes less time than its threads
-    in_threads = len(blocks) > 1
-    with parallel.one_thread():
-        apply = partial(parallel.ordered, "match") if in_threads else map
-        if len(query) > 1:
-            list(apply(search, blocks))
-        return list(apply(match, images))
+    if len(query) > 1:
+        _apply(search, blocks, len(points) * len(query))
+    return _apply(match, images, sum(len(rows) * min(len(rows), len(query)) for rows in images))
+
+
+def _apply(function: Callable[[Item], Result], items: list[Item], products: int) -> list[Result]:
+    """Apply a function to items, in threads if it computes more products than they are worth."""
+    if products > PRODUCTS_PER_TASK:
+        return list(parallel.ordered("match", function, items))
+    with parallel.one_thread(), span("match"):
+        return [function(item) for item in items]

@@ -218,3 +218,10 @@ def test_a_wrong_match_does_not_bend_the_pose_of_a_rig():
             errors.append(np.linalg.norm(relative.translation) / 8)
     # the noise alone moves some by 4 % of the distance
     assert len(errors) > 50 and np.sum(np.array(errors) > 0.03) < 8
+
+
+def test_a_rig_is_certain_although_its_pose_cannot_be_refined(monkeypatch):
+    sights = [sight(i, 40, 10) for i in range(3)]
+    monkeypatch.setattr(rig_pose, "_refined_by", lambda *_: None)
+    found = rig_pose.estimate(sights, GATE)
+    assert found.refusal is None and 0 < found.measures.uncertainty.position < 0.01

@@ -159,10 +159,10 @@ def test_features_retrieval_and_matches_are_those_of_torch(file, monkeypatch):
 
 @pytest.mark.parametrize("ratio_threshold", [None, 0.8])
 @pytest.mark.parametrize("number", [0, 1, 2, 300])
-@pytest.mark.parametrize("per_block", [7, 100])
-def test_images_of_points_are_matched_one_by_one(ratio_threshold, number, per_block, monkeypatch):
+@pytest.mark.parametrize("products", [700, 2**23])
+def test_images_of_points_are_matched_one_by_one(ratio_threshold, number, products, monkeypatch):
     """What images share is searched once, in parts, or at once where that is faster."""
-    monkeypatch.setattr(integers, "DESCRIPTORS_PER_BLOCK", per_block)
+    monkeypatch.setattr(integers, "PRODUCTS_PER_TASK", products)
     generator = np.random.default_rng(0)
     drawn = generator.standard_normal((100 + number, 16)).astype(np.float32)
     drawn[100 : 100 + number // 2] = drawn[: number // 2] + 0.02 * drawn[-(number // 2) or 100 :]

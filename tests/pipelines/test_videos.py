@@ -33,6 +33,13 @@ def video(plane):
     )
 
 
+def test_frames_of_a_video_share_a_camera_unless_they_are_panoramas(video, tmp_path):
+    given = {"outputs": tmp_path, "overwrite": False, "map_images": video, "query_images": None}
+    given |= {"camera_mode": None, "pairs": None}
+    assert videos.as_folders(given | {"panoramas": False})["camera_mode"] == "single"
+    assert videos.as_folders(given | {"panoramas": True})["camera_mode"] is None
+
+
 def test_a_map_and_queries_of_videos(video, plane, tmp_path, monkeypatch, run, refused, caplog):
     monkeypatch.setattr(frames_from_video, "NEAR", 0)
     monkeypatch.setattr(frames_from_video, "FAR", 0)
