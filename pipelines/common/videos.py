@@ -63,7 +63,7 @@ def as_folders(given: Mapping[str, Any]) -> dict[str, Any]:
             )
         found["map_images"] = _frames(map_images, frames, overwrite)
         found |= {key: given[key] or value for key, value in OF_VIDEO.items()}
-        if given["panoramas"]:  # their views have cameras of their own
+        if given.get("panoramas"):  # their views have cameras of their own
             found["camera_mode"] = given["camera_mode"]
     if query_images is not None and is_video(query_images):
         frames = _folder(query_images, outputs / "query_images", given["fps"])
