@@ -37,6 +37,8 @@ SUFFIX = ".hlm"
 FEATURES = "keypoints", "descriptors", "image_size"  # of an image, see `matchers.base.Matcher`
 # what a file may ask for
 MAX_DIM, MAX_GLOBAL, MAX_SIDE, LEAST_OCTAVE = 512, 2**14, 4096, -1
+# of these, a query of a large map needs little, all over the file
+PARTS = "retrieval", "images", "names", "descriptors", "coordinates", "visible"
 CACHED = 128  # images whose visible points stay in memory
 PROJECTION = re.compile(r"[\w+-]+(@\d+)?")  # a name, and a prefix of a nested one
 
@@ -197,7 +199,7 @@ class CompactMap:
             if not 0 < len(columns) <= width:
                 raise ValueError(f"coarse of {len(columns)} bytes an image")
             self._coarse = signs.Signs(columns, number)
-            for part in ("retrieval", "images", "names"):  # little of each, all over the file
+            for part in PARTS:
                 tensors.read_by_pages(arrays[part])
 
     @cached_property
