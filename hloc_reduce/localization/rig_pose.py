@@ -10,8 +10,7 @@ import pycolmap
 from ..utils import colmap
 from . import absolute_pose
 from . import gate as gates
-from .absolute_pose import CERTAIN
-from .gate import Gate
+from .gate import CERTAIN, Gate
 from .measures import (
     INDEPENDENT,
     MIN_MATCHES,
@@ -421,6 +420,7 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         found: all poses, of which some may be the same.
     """
     assert best.rig_from_world is not None
+    photos = [one.seen(best.rig_from_world) for one in sights]
     agreeing = _chosen(sights, best.rig_from_world, best.inliers)
     covariance = rig_covariance(agreeing, [one.cam_from_rig for one in sights])
     depth = _median_depth(agreeing)
@@ -428,11 +428,14 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
     for one in sights:
         images += [start + chosen for chosen in one.images]
         start += len(one.points2D)
-    others = [one for one in found if _shares_few(best, one)]
-    rivals = [rival for one in others if (rival := _rival(best, one, depth))]
+    different = [one for one in found if _shares_few(best, one)]
+    rivals = [rival for one in different if (rival := _rival(best, one, depth))]
+    most = int(np.argmax([joint_confidence([seen]) for seen in photos]))
+    others = [*photos[:most], *photos[most + 1 :]]
     measures = replace(
         best.measures,
         num_matches=start,
+        without_best_camera=joint_confidence(others) if others else None,
         agreement=agreement(np.concatenate(best.inliers), images),
         is_camera_given=True,
         focal_range=(0.0, np.inf),

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from hloc_reduce.localization import rig_pose
-from hloc_reduce.localization.gate import Gate
+from hloc_reduce.localization.gate import CERTAIN, Gate
 from hloc_reduce.localization.measures import Seen, covariance, rig_covariance
 from hloc_reduce.localization.rig_pose import Sight
 
@@ -225,3 +225,15 @@ def test_a_rig_is_certain_although_its_pose_cannot_be_refined(monkeypatch):
     monkeypatch.setattr(rig_pose, "_refined_by", lambda *_: None)
     found = rig_pose.estimate(sights, GATE)
     assert found.refusal is None and 0 < found.measures.uncertainty.position < 0.01
+
+
+@pytest.mark.parametrize("right", [0, 150])
+def test_noise_does_not_speak_against_a_pose_that_cameras_find_by_themselves(right):
+    """In the dark, most matches are of noise; one camera may see what only looks the same."""
+    found = rig_pose.estimate([sight(0, 150, 1500), sight(1, right, 1500 - right)], GATE)
+    assert found.measures.agreement < 0.12 and found.measures.confidence > CERTAIN
+    if right:
+        assert found.refusal is None and error(found)[0] < 0.02
+    else:
+        assert found.measures.without_best_camera < 8
+        assert found.refusal.startswith("too few matches of any image agree with the pose")
