@@ -259,13 +259,13 @@ def evidence(measures: Measures) -> Evidence:
     """Return what speaks for the matches of a pose.
 
     Of a photo in the dark, most matches with the right images may be of noise. A part that two
-    places share, as a poster, agrees as little. But hardly do photos of several cameras of a rig
-    agree with a wrong pose, each by such a part: if the others are certain without the best camera,
+    places share, as a poster, agrees as little. But hardly do several cameras of a rig agree with a
+    wrong pose, each by another such part: if a pose is certain without what the best of them sees,
     that counts as full agreement.
     """
     telling = min(max(1.0, measures.confidence), MOST_TELLING)
-    others = measures.without_best_camera
-    agreement = measures.agreement if others is None or others < CERTAIN else BEST.agreement
+    beyond = measures.beyond_best_camera
+    agreement = measures.agreement if beyond is None or beyond < CERTAIN else BEST.agreement
     return Evidence(float(np.log10(telling)), agreement)
 
 
@@ -463,7 +463,7 @@ RULES = (
         (
             (
                 "... also without agreement, for rigs",
-                f"a confidence of {CERTAIN:g} without the best camera",
+                f"a confidence of {CERTAIN:g} by what the best camera does not see",
             ),
         ),
     ),

@@ -430,12 +430,10 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         start += len(one.points2D)
     different = [one for one in found if _shares_few(best, one)]
     rivals = [rival for one in different if (rival := _rival(best, one, depth))]
-    most = int(np.argmax([joint_confidence([seen]) for seen in photos]))
-    others = [*photos[:most], *photos[most + 1 :]]
     measures = replace(
         best.measures,
         num_matches=start,
-        without_best_camera=joint_confidence(others) if others else None,
+        beyond_best_camera=_beyond_best(photos),
         agreement=agreement(np.concatenate(best.inliers), images),
         is_camera_given=True,
         focal_range=(0.0, np.inf),
@@ -443,6 +441,29 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         **_intrinsics(sights),
     )
     return replace(best, measures=measures, covariance=covariance)
+
+
+def _beyond_best(photos: Sequence[Seen]) -> float | None:
+    """Return the confidence by what the camera that has the highest one by itself does not see.
+
+    Cameras that see the same are no evidence of their own.
+
+    Args:
+        photos: the matches of each camera, with the pose that the rig gives it.
+
+    Returns:
+        None for a rig of one camera.
+    """
+    if len(photos) == 1:
+        return None
+    number = int(np.argmax([joint_confidence([seen]) for seen in photos]))
+    best, others = photos[number], []
+    size = best.camera.width, best.camera.height
+    for seen in (*photos[:number], *photos[number + 1 :]):
+        _, at = reprojection_errors(seen.points2D, seen.points3D, best.cam_from_world, best.camera)
+        beyond = ~((at >= 0) & (at <= size)).all(axis=1)
+        others.append(seen._replace(points2D=seen.points2D[beyond], points3D=seen.points3D[beyond]))
+    return joint_confidence(others)
 
 
 def _intrinsics(sights: Sequence[Sight]) -> dict:
