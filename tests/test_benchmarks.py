@@ -41,7 +41,7 @@ from hloc_reduce.datasets import true_poses
 from hloc_reduce.datasets.aachen import Aachen
 from hloc_reduce.demo import town
 from hloc_reduce.evaluation.poses import pose_error
-from hloc_reduce.localization import gate
+from hloc_reduce.localization import absolute_pose, gate
 from hloc_reduce.utils import colmap, images, videos
 from hloc_reduce.utils.cli import InputError
 from pipelines.batch import jobs
@@ -381,9 +381,9 @@ def test_no_pose_of_another_place_is_certain_and_most_right_ones_are(trials):
     poses = [row for row in trials if "measures" in row]
     kinds = "other", "turned"
     elsewhere = [row["measures"].confidence for row in poses if row["kind"] in kinds]
-    assert len(elsewhere) > 1500 and 1.5 * max(elsewhere) < gate.CERTAIN
+    assert len(elsewhere) > 1500 and 1.5 * max(elsewhere) < absolute_pose.CERTAIN
     own = [row for row in poses if row["kind"] in accuracy_tables.OWN and row["outcome"] == "true"]
-    certain = [row["measures"].confidence >= gate.CERTAIN for row in own]
+    certain = [row["measures"].confidence >= absolute_pose.CERTAIN for row in own]
     assert np.mean(certain) > 0.94  # with dark and blurred ones
 
 

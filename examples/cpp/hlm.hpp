@@ -233,7 +233,7 @@ public:
     }
 
 private:
-    static constexpr std::size_t VERSION = 4, BLOCK = 16, CANDIDATES = 5;
+    static constexpr std::size_t VERSION = 4, BLOCK = 16, LEAST = 250, CANDIDATES = 5;
     static constexpr double WHOLE = 2147483647;  // what stands for 1 in rotations
 
     static Vector cross(const Vector& a, const Vector& b) {
@@ -365,7 +365,7 @@ private:
         for (std::size_t i = 0; i < coarse.size; ++i)
             products[i % num_images()] += query.product(i / num_images(), coarse[i]);
         const std::size_t kept =
-            std::min(CANDIDATES * std::min(number, num_images()), num_images());
+            std::min(std::max(LEAST, CANDIDATES * std::min(number, num_images())), num_images());
         const auto end = images.begin() + static_cast<std::ptrdiff_t>(kept);
         std::nth_element(images.begin(), end, images.end(), [&](std::size_t a, std::size_t b) {
             return products[a] > products[b];

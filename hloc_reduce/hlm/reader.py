@@ -235,7 +235,7 @@ class CompactMap:
             similarity = self._every_sign.similarity(descriptor)
         else:
             rough = self._coarse.similarity(descriptor)
-            some = min(len(rough), signs.CANDIDATES * number)
+            some = min(len(rough), max(signs.LEAST, signs.CANDIDATES * number))
             rows = np.sort(np.argpartition(-rough, some - 1)[:some])
             packed = signs.columns(self._signs[rows])
             similarity = signs.Signs(packed, self._global_dim).similarity(descriptor)

@@ -9,7 +9,7 @@ import pycolmap
 
 from ..utils import colmap
 from . import gate as gates
-from .gate import ALTERNATIVES, CERTAIN, Gate
+from .gate import ALTERNATIVES, Gate
 from .hypotheses import Alternatives, alternative, rival, with_other_intrinsics
 from .measures import (
     FINEST,
@@ -29,6 +29,9 @@ from .projection import ALL, FOCAL, POSE, photo_scale, reprojection_errors
 
 SEED = 0
 SAMPLE = 500  # matches, at most, from which a pose is tried before all, or a rival is estimated
+# confidence of a pose at which no other matches are tried, one and a half times the highest of
+# photos of other places in results/trials
+CERTAIN = 85.0
 STRICT = 1 / 2  # of an inlier threshold, the next one with which a pose is estimated again
 LEAST_SCALE = 0.1  # pixels, the least error from which on a match counts less
 LEAST_RATIO = 0.1  # of inliers, pycolmap's default

@@ -159,8 +159,6 @@ class MatchKind(NamedTuple):
     max_mirrored: float
 
 
-# one and a half times the highest confidence of photos of other places in results/trials
-CERTAIN = 85.0
 MOST_TELLING = 20.0  # confidence: more does not count
 BEST = Evidence(float(np.log10(MOST_TELLING)), 1.0)
 STRICT = 0.8  # the largest ratio of a strict ratio test
@@ -256,17 +254,9 @@ DEFAULT_GATE = Gate()
 
 
 def evidence(measures: Measures) -> Evidence:
-    """Return what speaks for the matches of a pose.
-
-    Of a photo in the dark, most matches with the right images may be of noise. A part that two
-    places share, as a poster, agrees as little. But hardly do several cameras of a rig agree with a
-    wrong pose, each by another such part: if a pose is certain without what the best of them sees,
-    that counts as full agreement.
-    """
+    """Return what speaks for the matches of a pose."""
     telling = min(max(1.0, measures.confidence), MOST_TELLING)
-    beyond = measures.beyond_best_camera
-    agreement = measures.agreement if beyond is None or beyond < CERTAIN else BEST.agreement
-    return Evidence(float(np.log10(telling)), agreement)
+    return Evidence(float(np.log10(telling)), measures.agreement)
 
 
 def probability(measures: Measures, gate: Gate) -> float:
@@ -460,12 +450,6 @@ RULES = (
         f"{MATCH_KINDS['ratio'].default_min_probability:g} with a strict ratio test, "
         f"{MATCH_KINDS['lightglue'].default_min_probability:g} for LightGlue, else "
         f"{MATCH_KINDS['mutual'].default_min_probability:g} (`--min_probability`)",
-        (
-            (
-                "... also without agreement, for rigs",
-                f"a confidence of {CERTAIN:g} by what the best camera does not see",
-            ),
-        ),
     ),
     Rule(
         _mirrored,

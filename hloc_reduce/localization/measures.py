@@ -468,8 +468,6 @@ class Measures:
         off_centre_swapped: the same if its coordinates are swapped.
         alternatives: other poses by kind, a key of `gate.ALTERNATIVES`: of each kind the likeliest.
         mirror_image: confidence of the pose of the mirror image, None if that was not tried.
-        beyond_best_camera: confidence of the pose of a rig by what the camera that has the highest
-            one by itself does not see; None for a single photo.
     """
 
     num_matches: int = 0
@@ -490,7 +488,6 @@ class Measures:
     off_centre_swapped: float = 0.0
     alternatives: Mapping[str, Alternative] = field(default_factory=dict)
     mirror_image: float | None = None
-    beyond_best_camera: float | None = None
 
     def to_dict(self) -> dict:
         """Return them as JSON values, with None for infinite numbers."""

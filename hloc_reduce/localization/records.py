@@ -16,7 +16,7 @@ from .intrinsics import to_list
 from .measures import Measures
 from .references import Reference
 
-RECORDS = 35  # the version of the content of records, and of the gate
+RECORDS = 33  # the version of the content of records, and of the gate
 NUMBERS = ("num_matches", "num_without_point", "num_correspondences", "num_inliers")
 
 

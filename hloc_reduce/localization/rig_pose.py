@@ -10,7 +10,8 @@ import pycolmap
 from ..utils import colmap
 from . import absolute_pose
 from . import gate as gates
-from .gate import CERTAIN, Gate
+from .absolute_pose import CERTAIN
+from .gate import Gate
 from .measures import (
     INDEPENDENT,
     MIN_MATCHES,
@@ -420,7 +421,6 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         found: all poses, of which some may be the same.
     """
     assert best.rig_from_world is not None
-    photos = [one.seen(best.rig_from_world) for one in sights]
     agreeing = _chosen(sights, best.rig_from_world, best.inliers)
     covariance = rig_covariance(agreeing, [one.cam_from_rig for one in sights])
     depth = _median_depth(agreeing)
@@ -428,12 +428,11 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
     for one in sights:
         images += [start + chosen for chosen in one.images]
         start += len(one.points2D)
-    different = [one for one in found if _shares_few(best, one)]
-    rivals = [rival for one in different if (rival := _rival(best, one, depth))]
+    others = [one for one in found if _shares_few(best, one)]
+    rivals = [rival for one in others if (rival := _rival(best, one, depth))]
     measures = replace(
         best.measures,
         num_matches=start,
-        beyond_best_camera=_beyond_best(photos),
         agreement=agreement(np.concatenate(best.inliers), images),
         is_camera_given=True,
         focal_range=(0.0, np.inf),
@@ -441,29 +440,6 @@ def _measured(sights: Sequence[Sight], best: RigPose, found: list[RigPose]) -> R
         **_intrinsics(sights),
     )
     return replace(best, measures=measures, covariance=covariance)
-
-
-def _beyond_best(photos: Sequence[Seen]) -> float | None:
-    """Return the confidence by what the camera that has the highest one by itself does not see.
-
-    Cameras that see the same are no evidence of their own.
-
-    Args:
-        photos: the matches of each camera, with the pose that the rig gives it.
-
-    Returns:
-        None for a rig of one camera.
-    """
-    if len(photos) == 1:
-        return None
-    number = int(np.argmax([joint_confidence([seen]) for seen in photos]))
-    best, others = photos[number], []
-    size = best.camera.width, best.camera.height
-    for seen in (*photos[:number], *photos[number + 1 :]):
-        _, at = reprojection_errors(seen.points2D, seen.points3D, best.cam_from_world, best.camera)
-        beyond = ~((at >= 0) & (at <= size)).all(axis=1)
-        others.append(seen._replace(points2D=seen.points2D[beyond], points3D=seen.points3D[beyond]))
-    return joint_confidence(others)
 
 
 def _intrinsics(sights: Sequence[Sight]) -> dict:

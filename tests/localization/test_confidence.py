@@ -10,14 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from hloc_reduce.localization import absolute_pose, measures
-from hloc_reduce.localization.gate import (
-    CERTAIN,
-    DEFAULT_GATE,
-    MATCH_KINDS,
-    Gate,
-    probability,
-    refusal,
-)
+from hloc_reduce.localization.gate import DEFAULT_GATE, MATCH_KINDS, Gate, probability, refusal
 from hloc_reduce.localization.measures import (
     Measures,
     Seen,
@@ -273,7 +266,7 @@ def test_a_match_that_contradicts_all_others_does_not_bend_a_certain_pose():
         found = solve(keypoints, points, np.split(np.arange(len(points)), [46]))
         if not found.refusal:
             errors.append(motion(found.cam_from_world, true)[0])
-            assert found.confidence > CERTAIN
+            assert found.confidence > absolute_pose.CERTAIN
     assert len(errors) > 38 and max(errors) < 0.03 * 8
 
 
@@ -292,7 +285,7 @@ def test_a_few_wrong_matches_together_do_not_bend_a_certain_pose():
         keypoints = np.concatenate([keypoints, wrong])
         keypoints += 0.4 * generator.standard_normal(keypoints.shape)
         found = solve(keypoints, points)
-        assert found.refusal is None and found.confidence > CERTAIN
+        assert found.refusal is None and found.confidence > absolute_pose.CERTAIN
         errors.append(motion(found.cam_from_world, true)[0])
     assert max(errors) < 0.01 * 36
 
