@@ -233,7 +233,7 @@ public:
     }
 
 private:
-    static constexpr std::size_t VERSION = 4, BLOCK = 16, LEAST = 250, CANDIDATES = 5;
+    static constexpr std::size_t VERSION = 4, BLOCK = 16, LEAST = 500, CANDIDATES = 10;
     static constexpr double WHOLE = 2147483647;  // what stands for 1 in rotations
 
     static Vector cross(const Vector& a, const Vector& b) {

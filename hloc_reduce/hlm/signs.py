@@ -5,7 +5,7 @@ import numpy as np
 SIGNS = 1024  # bits of a descriptor, at most
 # of more images than this, a query is compared with the first signs of all, `COARSE` bytes of each,
 # and with all signs of the most similar ones: LEAST, or CANDIDATES for each image that is wanted
-FEW, COARSE, LEAST, CANDIDATES = 100_000, 64, 250, 5
+FEW, COARSE, LEAST, CANDIDATES = 100_000, 60, 500, 10
 BYTES = np.arange(256, dtype=np.uint8)[:, None]
 
 
