@@ -350,9 +350,8 @@ def most_telling(
         sums = _at_places(seen) @ each.reshape(len(each), POSE**2)
         of_places.append(sums.reshape(each.shape))
         total += each.sum(axis=0)
-    inverse = np.linalg.pinv(
-        total, hermitian=True
-    )  # of matches that do not determine the pose, too
+    # a pseudo-inverse, also of matches that do not determine the pose
+    inverse = np.linalg.pinv(total, hermitian=True)
     left = [np.linalg.det(np.eye(POSE) - inverse @ places) for places in of_places]
     most = int(np.argmin([part.min(initial=np.inf) for part in left]))
     seen, place = photos[most], photos[most].points2D[left[most].argmin()]
